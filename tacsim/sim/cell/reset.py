@@ -54,7 +54,7 @@ class CellReset:
         for name, start in self._starts.items():
             cell.place(name, start)
         for gripper, name in self._arm_of_gripper.items():
-            open_around(cell, gripper, name, before[name])
+            open_around(cell, gripper, name, float(se3.relative_position(before[name], cell.pose(name))[0]))
         self._clock.restart(episode=seed)
         for sensor in self._sensors.values():
             sensor.restart(seed)
@@ -77,17 +77,15 @@ class CellReset:
         self._clock.restart()
 
 
-def open_around(cell: Cell, gripper: str, arm: str, before: Pose) -> None:
-    """Opens a gripper by a gap on both sides of the object, wherever it has moved from `before`, where the object is in
-    its middle. Raises ValueError for an object that is too wide for it."""
-    here = cell.pose(arm)
-    turn = se3.relative_pose(here, cell.object_pose()).quaternion
-    along = float(se3.relative_position(before, here)[0])
+def open_around(cell: Cell, gripper: str, arm: str, aside: float = 0.0) -> None:
+    """Opens a gripper by a gap on both sides of the object, which is `aside` of its middle [m]. Raises ValueError for
+    an object that is too wide for it."""
+    turn = se3.relative_pose(cell.pose(arm), cell.object_pose()).quaternion
     size = float(rotated_bounding_size(cell.item.geometry, turn)[0])
-    width, drive = size + 2 * (tuning.OPEN_GAP + abs(along)), cell.grippers[gripper]
+    width, drive = size + 2 * (tuning.OPEN_GAP + abs(aside)), cell.grippers[gripper]
     if width > drive.max_width:
         raise ValueError(
-            f"the object is {size * 1e3:.4g} mm wide where gripper '{gripper}' closes, {abs(along) * 1e3:.3g} mm "
+            f"the object is {size * 1e3:.4g} mm wide where gripper '{gripper}' closes, {abs(aside) * 1e3:.3g} mm "
             f"from its middle; with gaps of {tuning.OPEN_GAP * 1e3:g} mm it must open by {width * 1e3:.4g} mm, and "
             f"opens by {drive.max_width * 1e3:.4g} mm: turn the object, or take a smaller one"
         )

@@ -23,7 +23,7 @@ WEIGHT = 0.1 * 9.81
 
 
 def gripped(cell: Cell, force: float, arm: str = "hand") -> Cell:
-    open_around(cell, "hand", arm, np.zeros(2))
+    open_around(cell, "hand", arm)
     DynamicMotion().grip(cell, {"hand": arm}, force)
     return cell
 
@@ -96,7 +96,7 @@ def test_an_opened_hand_drops_its_object(held: Cell) -> None:
 
 def test_an_object_that_has_landed_within_milliseconds_was_dropped_too() -> None:
     cell = hand(scene({"pedestal": 0.004}))
-    open_around(cell, "hand", "hand", np.zeros(2))
+    open_around(cell, "hand", "hand")
     DynamicMotion().grip(cell, {"hand": "hand"}, 3.0)
     cell.grippers["hand"].command(0.05, 1.0)
     with pytest.raises(ObjectDropped, match="'object' was dropped"):
@@ -112,7 +112,7 @@ def test_an_object_without_pedestal_and_grip_falls() -> None:
 
 def test_an_object_that_is_put_down_is_not_dropped() -> None:
     cell = hand(scene({"pedestal": 0.0}))
-    open_around(cell, "hand", "hand", np.zeros(2))
+    open_around(cell, "hand", "hand")
     DynamicMotion().grip(cell, {"hand": "hand"}, 3.0)
     cell.grippers["hand"].command(0.05, 1.0)
     let_pass(cell, 0.3)
@@ -145,12 +145,12 @@ def test_a_grip_that_cannot_hold_is_refused(thing: dict[str, object], force: flo
 def test_an_object_wider_than_the_hand_opens_is_refused() -> None:
     cell = hand(scene({"geometry": {"shape": "box", "size": [0.058, 0.01, 0.01]}}))
     with pytest.raises(ValueError, match=r"58 mm wide where gripper 'hand' closes.*must open by 62 mm.*opens by 60 mm"):
-        open_around(cell, "hand", "hand", np.zeros(2))
+        open_around(cell, "hand", "hand")
 
 
 def test_an_object_wider_than_the_gel_ends_at_its_housing() -> None:
     cell = hand(scene({"geometry": {"shape": "box", "size": [0.02, 0.03, 0.03]}}))
-    open_around(cell, "hand", "hand", np.zeros(2))
+    open_around(cell, "hand", "hand")
     cell.grippers["hand"].command(0.0, 60.0)
     with pytest.raises(LimitExceeded, match=r"wider than the gel and reaches .* into the housing"):
         let_pass(cell, 0.5)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tacsim import pose as se3
@@ -28,7 +27,7 @@ def resting(of: Scene | None = None, **gripper: Any) -> RestingCell:
     made = RestingCell(
         scene() if of is None else of, {"hand": ArmDescription()}, {"hand": replace(FREE_HAND, arm="hand", **gripper)}
     )
-    open_around(made, "hand", "hand", np.zeros(2))
+    open_around(made, "hand", "hand")
     return made
 
 
@@ -55,7 +54,7 @@ def test_the_pads_carry_the_weight_with_the_grip_that_was_asked() -> None:
 @pytest.mark.slow
 def test_it_rests_where_a_dynamic_cell_does() -> None:
     lived = hand()
-    open_around(lived, "hand", "hand", np.zeros(2))
+    open_around(lived, "hand", "hand")
     DynamicMotion().grip(lived, {"hand": "hand"}, 4.0)
     rested = held(4.0)
     assert rested.grippers["hand"].width == pytest.approx(lived.grippers["hand"].width, abs=10e-6)

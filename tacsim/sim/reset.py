@@ -52,6 +52,7 @@ class SimReset:
         arms, sensors = self._arms.values(), scene_world.sensors
         self._starts = find_starts(scene_world.pose, arms, sensors, self._placement, seed)
         if self._starts:
+            self._starts = _keep_clear(scene_world, self._starts)
             scene_world.place(self._starts)
         self._clock.restart(episode=seed)
         for sensor in self._sensors.values():
@@ -86,6 +87,21 @@ def find_starts(
         if arm.has_error:
             starts[arm.frame] = arm.true_pose(starts.get(arm.frame) or pose(arm.frame))
     return starts
+
+
+def _keep_clear(world: World, starts: Mapping[str, Pose]) -> dict[str, Pose]:
+    """Starts before which sensors have at least the gap of the scene, which is small: where an error takes a sensor
+    nearer to what it will touch, it begins as much farther back along its own z."""
+    truth, kept = world.truth(), dict(starts)
+    for name in set(starts).intersection(world.sensors):
+        here, there = world.pose(name), starts[name]
+        if truth is None:
+            nearer = float(se3.relative_position(here, there)[2])
+        else:
+            nearer = _gap_to_body(truth, here) - _gap_to_body(truth, there)
+        if nearer > 0.0:
+            kept[name] = se3.translated_along_z(there, -nearer)
+    return kept
 
 
 def start_key(scene: Scene, starts: Mapping[str, Pose], touch_force: float) -> tuple[object, ...]:

@@ -35,6 +35,18 @@ def test_arms_with_the_same_error_touch_at_the_same_place_simulated_and_mocked()
     assert mocked == pytest.approx(simulated, abs=0.25e-3)
 
 
+@pytest.mark.parametrize("error", ["[0, 0, -0.5 mm]", "[0, 0, -1.5 mm]", "[0, 0, 3 mm]"])
+def test_an_error_along_the_approach_presses_nothing(error: str) -> None:
+    """The gap of the scene is smaller: the sensor would begin inside the body."""
+    words = [*TINY, "scene.preset=learn", f"arms.lower.error.position={error}"]
+    with open_rig(load_rig("sim", task="squeeze", overrides=words)) as rig:
+        observation, truth = rig.reset(), rig.truth()
+    assert truth is not None
+    assert truth.height == pytest.approx(4e-3, rel=0.01)
+    assert -observation.arms["lower"].wrench[2] == pytest.approx(0.05, rel=0.2)
+    assert truth.poses["lower"].position[2] == pytest.approx(0.11e-3, abs=0.02e-3)
+
+
 def test_a_hand_with_an_error_measures_its_start_and_is_not_there() -> None:
     """It opens so far that its fingers are clear of the object on both sides."""
     error = "arms.hand.error.position=[0.6 mm, 0, 0.3 mm]"

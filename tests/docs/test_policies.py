@@ -26,7 +26,7 @@ def test_each_shipped_policy_has_its_card(path: Path) -> None:
     card, spec = CARDS[path.stem], read_policy_spec(path)
     assert f"SHA-256 `{sha256(path.read_bytes()).hexdigest()}`" in card
     assert f"| Trained on | {spec.trained['steps']:,} control steps, " in card
-    assert f"{spec.trained['training']['randomise']['draws']} " in card
+    assert f"{spec.trained['training']['randomise']['draws']:,} " in card
     assert f"period of {1e3 * spec.period:g} ms" in card
     assert spec.range is not None
     scene = spec.range.scene

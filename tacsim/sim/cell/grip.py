@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -51,15 +51,15 @@ def require_enough(cell: Cell, force: float, grippers: int) -> None:
 def _close(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, advance: Advance) -> None:
     seconds = 0.01
     widths = {gripper: cell.grippers[gripper].width for gripper in arm_of_gripper}
-    pads = [f"{gripper}/{side}" for gripper in arm_of_gripper for side in ("left", "right")]
+    pads = {gripper: [f"{gripper}/{side}" for side in ("left", "right")] for gripper in arm_of_gripper}
     least, waited, rested = force * (1 - tuning.GRIP_TOLERANCE), 0.0, 0.0
     while waited < tuning.MAX_REST_TIME:
         for gripper, width in widths.items():
-            touches = all(cell.normal_force(f"{gripper}/{side}") > 0 for side in ("left", "right"))
+            touches = all(cell.normal_force(pad) > 0 for pad in pads[gripper])
             widths[gripper] = 0.0 if touches else max(width - 2 * tuning.CLOSING_SPEED * seconds, 0.0)
             cell.grippers[gripper].command(widths[gripper], force)
         advance({}, seconds)
-        forces = [cell.normal_force(pad) for pad in pads]
+        forces = [_grip_force([cell.normal_force(pad) for pad in both]) for both in pads.values()]
         rested = rested + seconds if min(forces) >= least and cell.is_at_rest() else 0.0
         if rested >= tuning.MIN_REST_TIME:
             return
@@ -68,6 +68,12 @@ def _close(cell: Cell, arm_of_gripper: Mapping[str, str], force: float, advance:
         f"the grippers closed and found no grip: the least normal force is {min(forces):.3g} N of {force:.3g} N. Is "
         "the object between the fingers, and its face flat or round where they touch it?"
     )
+
+
+def _grip_force(pads: Sequence[float]) -> float:
+    """Mean of the normal forces of a gripper's pads [N]; 0 unless all touch. An object that cannot move aside presses
+    more on one of them, if it is not in the gripper's middle."""
+    return sum(pads) / len(pads) if min(pads) > 0 else 0.0
 
 
 def _wait_for_rest(cell: Cell, advance: Advance, what: str) -> None:

@@ -58,3 +58,15 @@ def test_a_hand_with_an_error_measures_its_start_and_is_not_there() -> None:
         middle = (truth.poses["left"].position + truth.poses["right"].position) / 2
         assert middle == pytest.approx([-0.6e-3, 0, 0.0383], abs=1e-9)  # the hand's z points down
         assert truth.objects["object"].position == pytest.approx([0, 0, 0.038])
+
+
+def test_a_hand_grips_a_handle_that_cannot_move_aside() -> None:
+    """One pad presses more than the other; their mean is the force of the motor."""
+    words = ["scene.preset=learn", "motion=flowing", "arms.hand.error.position=[0.3 mm, 0, 0]"]
+    with open_rig(load_rig("hand", task="drawer", overrides=words)) as rig:
+        observation, truth = rig.reset(), rig.truth()
+    assert truth is not None
+    left, right = (truth.forces[f"hand/{side}"] for side in ("left", "right"))
+    assert left < 0.8 * right
+    assert (left + right) / 2 == pytest.approx(observation.grippers["hand"].force, rel=1e-3)
+    assert observation.grippers["hand"].force == pytest.approx(6.0, rel=1e-3)

@@ -25,6 +25,7 @@ from robot.deploy.policy import load_policy, require_fit
 from robot.open import open_rig
 from robot.train.evaluate import HELD_OUT_SEED_OFFSET, Interval, bootstrap_interval, wilson_interval
 from tacsim.config import LoadedRig, load_rig
+from tacsim.gym.env import RESET_ERRORS
 from tacsim.interface import RigSpec
 from tacsim.models.policy import Training
 from tacsim.models.randomisation import Randomisation
@@ -81,7 +82,7 @@ class EpisodeResult:
     tactile_distance: float | None  # estimated from touch alone [SI]
     success: bool
     peak_force: float  # [N]
-    error: str = ""  # that ended it early
+    error: str = ""  # that ended it early, or why it did not begin
 
 
 def play_study(
@@ -156,7 +157,7 @@ def _play_in_process(
 
 def _describe_result(results: EpisodeResult, unit: Unit) -> str:
     if results.error or results.distance is None:
-        return results.error or "it did not begin"
+        return results.error or "no distance"
     return f"{unit.show(results.distance)} from the goal{'' if results.success else ', not reached'}"
 
 
@@ -234,6 +235,8 @@ def _play_episode(study: Study, side: Side, rig: Rig, loaded: LoadedRig, policy:
         episode: Episode = run_episode(
             rig, loaded_policy, task, steps, setup=EpisodeSetup(policy, number, canonical=canonical)
         )
+    except RESET_ERRORS as refused:  # the same for each policy: not reached
+        return EpisodeResult(policy, side, number, None, None, False, 0.0, error=f"did not begin: {refused}")
     except EpisodeFailed as failed:
         episode, error = failed.episode, str(failed)
     if not error and len(episode.steps) <= steps:

@@ -204,6 +204,15 @@ def test_play_study_interrupted_episode_is_not_recorded(tmp_path: Path, monkeypa
     assert (tmp_path / transfer.ROWS_FILE).read_text() == ""
 
 
+def test_a_twin_that_cannot_begin_counts_as_not_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out_of_reach = [*TINY_GELS, "task.goal=9 mm"]  # the body is lower
+    monkeypatch.setattr(transfer, "_load_rig", lambda *_: load_rig("sim", task="squeeze", overrides=out_of_reach))
+    rows = play_study(study(policies=("scripted",), episodes=2), tmp_path, lambda *_: None)
+    assert [(row.distance, row.success) for row in rows] == [(None, False)] * 4
+    assert all(row.error.startswith("did not begin: task.goal:") for row in rows)
+    assert [row.failures for row in summarise(rows)] == [2, 2]
+
+
 def test_summarise_gives_success_distance_and_agreement(tmp_path: Path) -> None:
     rows = [row for side in transfer.SIDES for row in fake(study(), side, 0, [("p", n) for n in range(5)])]
     rows.append(EpisodeResult("q", "twin", 0, None, None, False, 0.0, "no touch"))

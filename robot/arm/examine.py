@@ -239,7 +239,7 @@ def _check_workspace(name: str, config: UrArmConfig, place: FloatArray, file: st
         label,
         "fail",
         f"outside: {faces}. Back inside by {_format_shift(back)} on the pendant",
-        f"{_start_advice(file)}; or jog it there by hand (see 'way to start' below)",
+        f"{_start_advice(file)}; or jog it there by hand (see 'path to start' below)",
     )
 
 
@@ -250,7 +250,7 @@ def _describe_start_distance(name: str, config: UrArmConfig, placement: ArmPlace
     far = 1e3 * float(np.linalg.norm(target[:3] - here[:3]))
     shift = _format_shift(target[:3] - here[:3])
     words = f"{far:.0f} mm and {degrees:.0f} deg away: {shift}; on the pendant {_format_pose(target)}"
-    return Check(f"{name}: way to start", "ok", words)
+    return Check(f"{name}: path to start", "ok", words)
 
 
 def _check_force(name: str, config: UrArmConfig, placement: ArmPlacement, file: str) -> Check:

@@ -25,7 +25,7 @@ MAX_STALL_PERIODS = 10  # periods that the target waits, after missed periods, f
 
 # start_servo.py
 JOINT_SPEED, JOINT_ACCELERATION = 0.1, 0.5  # of the fastest joint, at most [rad/s, rad/s^2]
-OFF_PATH = 20e-3  # an arm with a joint farther than this from the way has left it [rad]
+OFF_PATH = 20e-3  # an arm with a joint farther than this from the path has left it [rad]
 
 # driver.py
 BRAKING_REACTION_TIME = 0.05  # from a picture that shows a touch to an arm that brakes [s]

@@ -73,7 +73,7 @@ def hash_data(data_set: Path) -> str:
 
 
 def _card(task: str, recordings: list[Path], data: Path, command: str, digest: str) -> str:
-    """The card of a data set as Markdown; its head tells `datasets` where the rows are."""
+    """The card of a data set as Markdown; its head says to `datasets` where the rows are."""
     info = json.loads((data / "meta/info.json").read_text(encoding="utf-8"))
     known, name = load_model(BenchmarkTask, task), printable_line(Path(task).stem)
     columns = "\n".join(
@@ -134,7 +134,7 @@ Drawn for each episode, by a seed that no test of the benchmark uses:
 |---|---|
 {values}
 
-Limits: simulated only; the expert acts by what no sensor tells, so some of its actions cannot be learned from the
+Limits: simulated only; the expert acts by what no sensor measures, so some of its actions cannot be learned from the
 columns alone.
 
 Made by

@@ -256,7 +256,7 @@ class SensorModel(Config):
     lighting: Lighting = Lighting()
     # Calibrated on a real sensor: takes the place of the lights; the background stays that of `lighting`.
     photometric: PhotometricModel | None = None
-    darkness: DarknessModel | None = None  # the same of a light that tells depth and no direction
+    darkness: DarknessModel | None = None  # the same of a light that shows depth and no direction
     markers: Markers | None = None
     # Where the picture of `geometry` lies in the camera's own, which is delivered then; None: it is the camera's own.
     view: GelView | None = None

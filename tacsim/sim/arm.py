@@ -75,7 +75,7 @@ class SimArm:
         keep_out: frames to stay away from, and how far [m]; targets are shortened at these spheres.
         error: measured pose of its frame, relative to the true one; None: no error.
         delay: its states are those of so many periods ago.
-        noise: of its force sensor, in what it tells; its guard feels the force itself. None: no noise.
+        noise: of its force sensor, in what it reports; its guard feels the force itself. None: no noise.
     """
 
     def __init__(

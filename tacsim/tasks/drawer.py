@@ -152,8 +152,8 @@ class ScriptedDrawer:
         self._lag = lag
         if not self._arrived:
             self._change_force(lag - before)
-        way = float((arm.pose.position - self._start.position) @ self._direction)
-        left = np.inf if self._through else self._config.goal - (way - lag)
+        hand_travel = float((arm.pose.position - self._start.position) @ self._direction)
+        left = np.inf if self._through else self._config.goal - (hand_travel - lag)
         grip = GripperTarget(0.0, self._force)
         self._arrived = self._arrived or left < tuning.ARRIVAL_LEFT
         if self._arrived:

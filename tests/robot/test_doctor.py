@@ -232,7 +232,7 @@ def bad(checks: dict[str, Check]) -> dict[str, str]:
 def test_a_sound_rig_passes_every_check(monkeypatch: pytest.MonkeyPatch, file: Path) -> None:
     checks = looked(monkeypatch, file)
     kinds = {"network", "PolyScope", "model", "ready", "RTDE", "limits", "start"}
-    kinds |= {"pose", "workspace", "way to start", "force", "payload", "TCP", "speed slider"}
+    kinds |= {"pose", "workspace", "path to start", "force", "payload", "TCP", "speed slider"}
     assert set(checks) == {f"left: {kind}" for kind in kinds} | {"finger: camera"}
     camera = checks.pop("finger: camera")
     assert bad(checks) == {}

@@ -2,7 +2,7 @@
 
 Physics has two hashes. `motion` is of the bits of a short reference motion: it changes if and only if results change
 there, and it does not change with a comment. It depends on the vector width of the processor, because sums are ordered
-by it. `source` is of the source files of the simulator: it is the same on all machines, and tells whether the program
+by it. `source` is of the source files of the simulator: it is the same on all machines, and shows whether the program
 could be another one.
 """
 

@@ -99,7 +99,7 @@ def hide_from_compiler(zero, index):
 
 @ti.func
 def bounded(index, width: ti.template()):
-    """Returns `index` of an item with `width` numbers. It tells the compiler that the index is neither negative nor
+    """Returns `index` of an item with `width` numbers. It shows the compiler that the index is neither negative nor
     large, so that the compiler finds neighbours."""
     if ti.static(ON_DEVICE):
         return index

@@ -59,22 +59,22 @@ class FreeDrive:
         """Plans the next `seconds`: to a pose of the tool; None: to its last target."""
         self._target = self._target if target is None else target
         self._start = site_pose(self._data, self._tool)
-        way = se3.pose_difference(self._start, self._target)
-        self._ramp = Ramp.plan(way, self._last_speed, seconds)
+        displacement = se3.pose_difference(self._start, self._target)
+        self._ramp = Ramp.plan(displacement, self._last_speed, seconds)
 
     def apply(self, time: float) -> None:
         """Before a step that begins `time` [s] after `begin`: what makes it follow its plan."""
         dt = float(self._model.opt.timestep)
         after = time + dt
-        self._last_speed, way = self._ramp.speed(after), self._ramp.displacement(after)
+        self._last_speed, displacement = self._ramp.speed(after), self._ramp.displacement(after)
         # quaternions as plain numbers: this is called in each timestep
-        tool = turned_by(self._start.quaternion.tolist(), way[3:].tolist())
+        tool = turned_by(self._start.quaternion.tolist(), displacement[3:].tolist())
         arm = rotated(self._tool_from_flange.position.tolist(), tool)
         to = product(tool, self._tool_from_flange.quaternion.tolist())
         place = self._data.qpos[self._places : self._places + 7]
         w, x, y, z = place[3:].tolist()
         speed = self._data.qvel[self._speeds : self._speeds + 6]
-        speed[:3] = (self._start.position + way[:3] + arm - place[:3]) / dt
+        speed[:3] = (self._start.position + displacement[:3] + arm - place[:3]) / dt
         # MuJoCo has a free body's spin in its own axes
         speed[3:] = np.array(rotation_vector(product((-x, -y, -z, w), to))) / dt
 

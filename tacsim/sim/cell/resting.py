@@ -99,17 +99,17 @@ class RestingCell(Cell):
         for arm, target in targets.items():
             self.place(arm, target)
         (width, force), here = self._gripper.target, self._gripper.width
-        way = 2 * self._gripper.max_speed * seconds
+        max_change = 2 * self._gripper.max_speed * seconds
         try:
             if width < here:
                 before = self.held.snapshot(self.grip_number)
                 states, from_width = (yield self._command(here, force, seconds)), here
                 if here - 2 * float(states.closings[0]) < width:  # it meets nothing before its width
                     self.held.restore(self.grip_number, before)
-                    from_width = max(width, here - way)
+                    from_width = max(width, here - max_change)
                     states = yield self._command(from_width, None, seconds)
             else:
-                from_width = min(width, here + way)
+                from_width = min(width, here + max_change)
                 states = yield self._command(from_width, None, seconds)
         except ValueError as failure:
             raise LimitExceeded(str(failure)) from failure

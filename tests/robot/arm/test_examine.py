@@ -98,10 +98,10 @@ def test_the_way_to_the_start_is_that_of_the_pendant(mock: MockUR) -> None:
     sensor = frames.world_from_base @ matrix(target) @ np.linalg.inv(matrix(told))
     sensor = sensor @ frames.flange_from_tool @ frames.tool_from_sensor
     assert np.allclose(sensor, se3.to_matrix(config.start.pose), atol=1e-9)
-    way = by_name(list(check_placement("arm", config, now, config.start.pose, "f")))["arm: way to start"]
+    path = by_name(list(check_placement("arm", config, now, config.start.pose, "f")))["arm: path to start"]
     for axis, value in zip("XYZ", target[:3] - now.reading.tcp_pose[:3], strict=True):
-        assert f"{axis} {round(1e3 * value):+d}" in way.found
-    assert f"X {1e3 * target[0]:.1f} Y {1e3 * target[1]:.1f} Z {1e3 * target[2]:.1f} mm" in way.found
+        assert f"{axis} {round(1e3 * value):+d}" in path.found
+    assert f"X {1e3 * target[0]:.1f} Y {1e3 * target[1]:.1f} Z {1e3 * target[2]:.1f} mm" in path.found
 
 
 def _with(reading: ControllerReading, **changes: object) -> ControllerReading:

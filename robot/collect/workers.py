@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from robot.common.process import ProcessPool
+from robot.common.process_pool import ProcessPool
 from tacsim.geometry.tiles import share_tiles
 
 PIECES_PER_WORKER = 2  # pieces for each worker that are queued or being made

@@ -6,7 +6,7 @@ robot.errors, it is the complete text of that error.
 
 A child ends when its standard input ends or its parent is gone, so it never outlives the parent. Only the parent gets
 the signals that end a program (Ctrl-C, SIGTERM, a lost terminal); it ends its children in order. The processes of a
-ProcessPool behave in the same way.
+pool (robot.common.process_pool) behave in the same way.
 
 Children are not started by multiprocessing: its spawn runs the main module of the user's program again, so a script
 without `if __name__ == "__main__"` could not open an arm.
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -25,10 +24,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, ParamSpec, TypeVar
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +42,6 @@ MAX_LINE = 2**20  # of a line [bytes]
 END_TIMEOUT = 1.0  # from a request to end until a child is killed [s]
 PARENT = "TACSIM_PARENT"  # environment variable of a child: its parent's process id at the start
 END_SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
-
-Given = ParamSpec("Given")
-Result = TypeVar("Result")
 
 
 @contextlib.contextmanager
@@ -371,34 +365,3 @@ def read_message(pipe: IO[bytes]) -> Message | None:
             return None
         arrays[name] = np.frombuffer(data, dtype).reshape(shape)
     return message, arrays
-
-
-class ProcessPool(ProcessPoolExecutor):
-    """A ProcessPoolExecutor whose processes end when this process ends (also by kill -9), and at once if an exception
-    leaves its block. Only this process gets the signals that end a program.
-
-    begin, given: function and arguments, called in each process before its first task.
-    """
-
-    def __init__(self, processes: int, begin: Callable[..., object] | None = None, given: tuple[Any, ...] = ()) -> None:
-        context = multiprocessing.get_context("spawn")  # Taichi does not survive a fork
-        super().__init__(processes, context, _start_process, (os.getpid(), begin, given))
-
-    def submit(self, work: Callable[Given, Result], /, *args: Given.args, **more: Given.kwargs) -> Future[Result]:
-        """As ProcessPoolExecutor.submit, which starts processes when there are tasks for them."""
-        with without_working_folder(), blocking_signals():
-            return super().submit(work, *args, **more)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        if kind is not None:
-            for process in multiprocessing.active_children():
-                process.kill()  # it does not get other signals (`blocking_signals`)
-        return super().__exit__(kind, error, trace)
-
-
-def _start_process(parent: int, begin: Callable[..., object] | None, given: tuple[Any, ...]) -> None:
-    end_with_parent(parent)
-    if begin is not None:
-        begin(*given)

@@ -106,7 +106,8 @@ def run_episode(
 
     Raises:
         IncompatibleRig: the rig lacks something that policy or task needs; nothing has moved.
-        GoalOutOfReach: no policy could bring this body to the task's goal; only the reset was done.
+        GoalOutOfReach: no policy could bring this body to the task's goal; only the reset was done. Also the errors of
+            `rig.reset`.
         EpisodeFailed: policy, rig or recorder failed; the arms are stopped, the exception has the episode.
     """
     if steps is not None and steps < 0:

@@ -8,7 +8,7 @@ from concurrent.futures import CancelledError, Future
 from pathlib import Path
 
 from robot.common import Closing
-from robot.common.process import ProcessPool
+from robot.common.process_pool import ProcessPool
 from robot.serve.errors import Refused, describe
 
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from robot.common.process import ProcessPool, blocking_signals, without_working_folder
+from robot.common.process import blocking_signals, without_working_folder
+from robot.common.process_pool import ProcessPool
 from robot.studies.tuning import FINE_STEP_SHARE, MIN_REWARD_FALL, PEAK_PLACE
 from tacsim.config import load_rig
 from tacsim.interface import Action, Observation, Pose, TactileFrame, Truth

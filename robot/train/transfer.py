@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from robot.common import loopback_host
-from robot.common.process import ProcessPool
+from robot.common.process_pool import ProcessPool
 from robot.deploy.control_loop import EpisodeFailed, EpisodeSetup, run_episode
 from robot.deploy.onnx_policy import OnnxPolicy
 from robot.deploy.policy import load_policy, require_fit

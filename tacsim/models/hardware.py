@@ -189,8 +189,8 @@ class UrArmConfig(ArmConfig):
     start: Placement | None = None  # world_from_sensor, clear of everything; None: where the scene of a mock rig says
     link_timeout: Annotated[Time, Field(ge=0.01, le=2.0)] = 50e-3  # without a package, the link is lost [s]
     # Without an action for so long the arm holds. An action reaches at most limits.speed x action_timeout ahead: an arm
-    # that a program leaves hanging comes to rest within that distance. Two control periods are enough: no two actions that
-    # each come within their own period are farther apart [s].
+    # that a program leaves hanging comes to rest within that distance. Two control periods are enough: no two actions
+    # that each come within their own period are farther apart [s].
     action_timeout: Annotated[Time, Field(ge=0.02, le=60.0)] = 0.2
     # The arm holds, whatever is asked, when the newest observation is older [s].
     observation_timeout: Annotated[Time, Field(ge=0.02, le=600.0)] = 1.0

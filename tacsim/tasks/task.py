@@ -18,7 +18,7 @@ from tacsim.limits import ActionError
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import TaskConfig
 
-# Observations of one episode, in order from the reset on -> the distance of each, felt [m]; None: no sensor measures it.
+# Observations of one episode, in order from the reset on -> the distance of each, felt [m]; None: not measured.
 Estimator = Callable[[Observation], float | None]
 
 

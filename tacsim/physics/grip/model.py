@@ -94,8 +94,8 @@ class GuideSupport:
 
     axis: ArrayLike  # 0, 1, 2: world x, y, z
     friction: ArrayLike = 0.0  # [N], however the object is loaded
-    # Of the damper, over the time that a step stands for: it resists by the share of the pads' displacement that the object went
-    # in the step before [N/m]
+    # Of the damper, over the time that a step stands for: it resists by the share of the pads' displacement that the
+    # object made in the step before [N/m]
     drag: ArrayLike = 0.0
     room: ArrayLike = (-math.inf, math.inf)  # (2,) or (n, 2) stops, along the axis from where the object is now [m]
 

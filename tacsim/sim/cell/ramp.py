@@ -22,7 +22,7 @@ class Ramp:
     @classmethod
     def plan(cls, displacement: FloatArray, velocity: FloatArray, seconds: float) -> Ramp:
         """The path that has gone `displacement` after `seconds`. It does not stop there: a motion that goes on at
-        the same speed shakes nothing. A stop overshoots by some percent of a period's displacement, and is back at its end."""
+        the same speed shakes nothing. A stop overshoots by some percent of the displacement, and is back at its end."""
         rise = RISE_SHARE * seconds
         return cls(velocity, (displacement - velocity * seconds) / (seconds - rise / 2), rise)
 

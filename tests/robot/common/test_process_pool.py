@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from robot.common.process import ProcessPool
+from robot.common.process_pool import ProcessPool
 
 LONG = 600.0  # a piece of work that nobody waits for [s]
 LEFT_ALONE = f"""
 import os, time
-from robot.common.process import ProcessPool
+from robot.common.process_pool import ProcessPool
 if __name__ == "__main__":
     with ProcessPool(2) as pool:
         print(*{{pool.submit(os.getpid).result() for _ in range(4)}}, flush=True)

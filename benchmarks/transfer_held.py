@@ -28,10 +28,13 @@ class HeldTask(StrEnum):
     drawer = "drawer"
 
 
-# One box, as of the twins: the shipped training of hold has boxes of many sizes. The others have one object.
+# One box, gripped as those of the twins: the shipped training of hold has boxes of many sizes. The others have one object.
 ONE_BOX = """randomise={draws: 128, values: {
     scene.object.mass: {log_uniform: [0.03, 0.25]}, scene.object.friction: {uniform: [0.35, 0.9]},
-    scene.gel.material.youngs_modulus: {normal: [0.145 MPa, 0.02 MPa], within: [0.1 MPa, 0.2 MPa]}}}"""
+    scene.gel.material.youngs_modulus: {normal: [0.145 MPa, 0.02 MPa], within: [0.1 MPa, 0.2 MPa]},
+    scene.object.grip: {uniform: [[0 mm, -1 mm, -1 mm], [0 mm, 1 mm, 1 mm]]},
+    arms.hand.error.position: {uniform: [[-0.3 mm, -0.3 mm, -0.3 mm], [0.3 mm, 0.3 mm, 0.3 mm]]},
+    arms.hand.error.rotation: {uniform: [[-0.02, -0.02, -0.02], [0.02, 0.02, 0.02]]}}}"""
 # What all students of a task see: all that its shipped student sees, but for the gels.
 HAND = {"hold": ("wrench", "grip"), "turn": ("grip",), "drawer": ("wrench", "moved", "grip")}
 # What `depth` sees in addition: all that comes from the height of the gels. The shipped student of drawer finds the

@@ -110,6 +110,15 @@ def test_an_object_without_pedestal_and_grip_falls() -> None:
         let_pass(cell, 0.1)
 
 
+def test_a_heavy_bar_that_is_held_off_its_centre_begins_when_it_swings_no_more() -> None:
+    bar = {"geometry": {"shape": "box", "size": [0.016, 0.08, 0.008]}, "mass": 0.2, "friction": 0.9}
+    off_centre = {"grip": [0.0, 0.014, 0.0], "pedestal": 0.06}
+    cell = gripped(hand(scene({**bar, **off_centre}, gel={"housing": None})), 8.0)
+    moment = cell.wrench("hand")[3:]
+    assert np.linalg.norm(moment) == pytest.approx(0.2 * 9.81 * 0.014, rel=0.05)
+    assert cell.object_speed()[1] < 0.02
+
+
 def test_an_object_that_is_put_down_is_not_dropped() -> None:
     cell = hand(scene({"pedestal": 0.0}))
     open_around(cell, "hand", "hand")

@@ -19,7 +19,7 @@ from benchmarks.transfer import run_tacsim, set_options
 from tacsim.config import load_model
 from tacsim.models.policy import Training
 
-ROUNDS = 4  # of each training: 3,840 control steps of hold, 5,120 of turn, 6,400 of drawer
+ROUNDS = 4  # of each training: 7,680 control steps of hold, 5,120 of turn, 12,800 of drawer
 
 
 class HeldTask(StrEnum):

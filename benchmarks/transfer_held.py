@@ -28,7 +28,7 @@ class HeldTask(StrEnum):
     drawer = "drawer"
 
 
-# One box, gripped as those of the twins: the shipped training of hold has boxes of many sizes. The others have one object.
+# One box, gripped as those of the twins: the shipped training of hold has boxes of many sizes. Others have one object.
 ONE_BOX = """randomise={draws: 128, values: {
     scene.object.mass: {log_uniform: [0.03, 0.25]}, scene.object.friction: {uniform: [0.35, 0.9]},
     scene.gel.material.youngs_modulus: {normal: [0.145 MPa, 0.02 MPa], within: [0.1 MPa, 0.2 MPa]},

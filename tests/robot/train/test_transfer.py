@@ -94,8 +94,8 @@ def test_the_twin_of_a_hand_is_another_hand(task: str) -> None:
     assert own.motion == "flowing" and hidden.motion == "dynamic"  # that of its training, and the rig's
     assert hidden.scene is not None and own.scene is not None and hidden.scene.object is not None
     assert own.scene.object is not None
-    own_grip = own.scene.object.grip[2]  # of drawer drawn by its training, too
-    assert 0.0 != hidden.scene.object.grip[2] != own_grip and (own_grip != 0.0) == (task == "drawer")
+    own_grip = own.scene.object.grip[2]  # of hold and drawer drawn by their trainings, too
+    assert 0.0 != hidden.scene.object.grip[2] != own_grip and (own_grip != 0.0) == (task != "turn")
     assert getattr(hidden.task, "goal", None) == getattr(own.task, "goal", None)
     for name in ("left", "right"):
         seen, usual = (each.sensors[name] for each in (hidden, own))

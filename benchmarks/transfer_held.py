@@ -37,10 +37,13 @@ ONE_BOX = """randomise={draws: 128, values: {
     arms.hand.error.rotation: {uniform: [[-0.02, -0.02, -0.02], [0.02, 0.02, 0.02]]}}}"""
 # What all students of a task see: all that its shipped student sees, but for the gels.
 HAND = {"hold": ("wrench", "grip"), "turn": ("grip",), "drawer": ("wrench", "moved", "grip")}
-# What `depth` sees in addition: all that comes from the height of the gels. The shipped student of drawer finds the
-# handle by how far its contact is `dragged`; that of turn finds the angle by edges (`turned`), which are slopes of the
-# height.
-HEIGHT = {"hold": ("area", "depth"), "turn": ("area", "depth", "turned"), "drawer": ("area", "depth", "dragged")}
+# What `depth` sees in addition: all that comes from the height of the gels. The shipped students of hold and drawer see
+# how far the contact is `dragged`; that of turn finds the angle by edges (`turned`), which are slopes of the height.
+HEIGHT = {
+    "hold": ("area", "depth", "dragged"),
+    "turn": ("area", "depth", "turned"),
+    "drawer": ("area", "depth", "dragged"),
+}
 # Pictures are what one policy sees: 320 x 240 px of a sensor, four by four in one. The others see none.
 PICTURES = [
     f"sensors.{side}.model.geometry.{key}"

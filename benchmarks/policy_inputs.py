@@ -17,7 +17,7 @@ from benchmarks.transfer import run_tacsim, set_options
 
 SPLITS = ("test", "shift-all")
 MAPS = ["features.maps=[height]", "dagger.epochs=20"]  # a network with maps learns in fewer epochs
-EQUAL_BUDGET = ["randomise.draws=128", "dagger.rounds=20"]  # of the students of hold: 19,200 control steps
+EQUAL_BUDGET = ["randomise.draws=128", "dagger.rounds=20"]  # of the students of hold: 38,400 control steps
 # task -> what the student sees -> training file and its changes
 POLICIES: dict[str, dict[str, tuple[str, list[str]]]] = {
     "squeeze": {

@@ -18,7 +18,8 @@ from tacsim.limits import ActionError
 from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import TaskConfig
 
-# Observations of one episode, in order from the reset on -> the distance of each, felt [m]; None: not measured.
+# Takes the observations of one episode in their order, from the reset on. Returns the distance from the goal, estimated
+# from touch alone [m]; None where no sensor measures it.
 Estimator = Callable[[Observation], float | None]
 
 

@@ -83,7 +83,7 @@ def test_an_arm_out_of_its_box_is_told_with_all_that_differs_from_the_file(
     assert told["speed slider"].state == "ok" and "program STOPPED" in told["ready"].found
 
 
-def test_the_way_to_the_start_is_that_of_the_pendant(mock: MockUR) -> None:
+def test_the_path_to_the_start_is_that_of_the_pendant(mock: MockUR) -> None:
     """Jogging by the difference that is told brings the pendant's pose to the one that is told, and the sensor to its
     start, whatever TCP the pendant has."""
     config = shipped()

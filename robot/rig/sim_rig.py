@@ -23,7 +23,7 @@ from tacsim.physics.world import World, make_world
 from tacsim.rig import Rig
 from tacsim.sim.arm import SimArm, wrench_noise_source
 from tacsim.sim.clock import SimClock
-from tacsim.sim.mount import elastic_mount
+from tacsim.sim.mount import elastic_mounts
 from tacsim.sim.reset import SimReset
 from tacsim.sim.scene_world import SceneWorld, StatePool
 from tacsim.sim.sensor import SimSensor
@@ -50,7 +50,7 @@ class Simulation:
             self.arms[name].set_measurement_errors(
                 pose_error(arm.error), arm.delay, wrench_noise_source(arm.noise, name)
             )
-            self.arms[name].set_mount(elastic_mount(arm.mount, self.clock.period))
+        _mount_arms(self.arms, config)
 
 
 def open_sim(config: RigConfig, check: Callable[[RigSpec], None] | None = None) -> Rig:
@@ -107,7 +107,7 @@ def simulate(
         arms[name] = SimArm(
             world, clock, frames[name], max_shift, max_turn, limits, keep_out, pose_error(arm.error), arm.delay, noise
         )
-        arms[name].set_mount(elastic_mount(arm.mount, config.period))
+    _mount_arms(arms, config)
     task = config.task
     touch_force, placement = (None, 0.0) if task is None else (task.touch_force, task.placement)
     rig = Rig(
@@ -141,6 +141,12 @@ def make_gel_monitor(config: RigConfig, sensors: Mapping[str, SimSensor]) -> Gel
         return GelMonitor({name: sensor.spec for name, sensor in sensors.items()}, limits, {}) if limits else None
     except ValueError as failure:
         raise CannotOpen(f"rig '{config.name}': {failure}") from None
+
+
+def _mount_arms(arms: Mapping[str, SimArm], config: RigConfig) -> None:
+    configs = {name: arm.mount for name, arm in parts_of(config.arms, SimArmConfig).items()}
+    for name, mount in elastic_mounts(configs, config.period).items():
+        arms[name].set_mount(mount, [arm.frame for other, arm in arms.items() if other != name])
 
 
 def _frame_of_arm(config: RigConfig, scene: Scene) -> dict[str, str]:

@@ -96,11 +96,15 @@ class SimArm:
         self._limits, self._keep_out = limits, tuple(keep_out)
         self._region = None if limits is None else limits.region
         self._mount: ElasticMount | None = None
+        self._opposite: tuple[str, ...] = ()
         self.set_measurement_errors(error, delay, noise)
 
-    def set_mount(self, mount: ElasticMount | None) -> None:
-        """What holds the frame to the arm, from the next episode on; None: it is rigid. A mount belongs to one arm."""
-        self._mount = mount
+    def set_mount(self, mount: ElasticMount | None, opposite: Iterable[str] = ()) -> None:
+        """What holds the frame to the arm, from the next episode on; None: it is rigid. A mount belongs to one arm.
+
+        opposite: frames of the other arms, which press against this one.
+        """
+        self._mount, self._opposite = mount, tuple(opposite)
 
     def set_measurement_errors(self, error: Pose | None, delay: int, noise: WrenchNoiseSource | None = None) -> None:
         """Another error, delay and noise, from the next episode on."""
@@ -180,7 +184,9 @@ class SimArm:
         """Moves the frame to where it is once the arm holds it at `arm`."""
         if self._mount is not None:
             here = self._world.pose(self.frame).position
-            arm = Pose(self._mount.move_arm(arm.position, here, self._world_force()), arm.quaternion)
+            others = [self._world.pose(frame).position for frame in self._opposite]
+            opposite = np.mean(others, axis=0) if others else None
+            arm = Pose(self._mount.move_arm(arm.position, here, self._world_force(), opposite), arm.quaternion)
         self._clock.command(self.frame, arm, limited=limited)
 
     def stop(self) -> None:

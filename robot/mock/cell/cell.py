@@ -31,7 +31,7 @@ from tacsim.interface import FloatArray, Pose, SensorSpec, TactileFrame, Truth
 from tacsim.models.hardware import CameraSensorConfig, MockCameraConfig, UrArmConfig, parts_of
 from tacsim.models.rig import RigConfig
 from tacsim.models.sensor import SensorModel
-from tacsim.sim.mount import elastic_mount
+from tacsim.sim.mount import elastic_mounts
 
 MIN_STEP_INTERVAL = 5e-3  # between two steps in `run_free` [s]
 
@@ -61,7 +61,7 @@ class MockCell(Closing):
         self._delays = {name: mock.delay for name, (_, mock) in cameras.items()}
         self._scene_frame: SceneFrame | None = None
         self._placed: dict[str, Pose] = {}  # world_from_sensor of the simulated sensors after the last motion
-        mounts = {name: elastic_mount(arm.mock.mount, config.period) for name, arm in self._arms.items() if arm.mock}
+        mounts = elastic_mounts({name: arm.mock.mount for name, arm in self._arms.items() if arm.mock}, config.period)
         self._mounts = {name: mount for name, mount in mounts.items() if mount is not None}
         self._pushed: dict[str, tuple[NDArray[np.uint8], int]] = {}  # by camera: its image, and the number of the image
         self._late: dict[str, deque[NDArray[np.uint8]]] = {}  # by camera: the last images, oldest first
@@ -194,7 +194,10 @@ class MockCell(Closing):
             sensor = self._sensor_on[arm]
             held, here = poses[sensor], self._placed[sensor]
             force = se3.rotate(here, self._scene_frame.wrenches[sensor][:3])
-            poses[sensor] = Pose(mount.move_arm(held.position, here.position, force), held.quaternion)
+            others = [pose.position for name, pose in self._placed.items() if name != sensor]
+            opposite = np.mean(others, axis=0) if others else None
+            moved = mount.move_arm(held.position, here.position, force, opposite)
+            poses[sensor] = Pose(moved, held.quaternion)
         return poses
 
     def _distribute(self, scene_frame: SceneFrame, pause: float = 0.0) -> Mapping[str, int]:

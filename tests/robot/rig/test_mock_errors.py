@@ -42,3 +42,21 @@ def test_mock_mount_gives_way_and_the_arm_does_not_observe_it() -> None:
     given = truth.poses["upper"].position - arm.pose.position
     assert given[2] == pytest.approx(-arm.wrench[2] / 2000.0, rel=0.02) and given[2] > 0.1e-3
     assert truth.poses["lower"].position == pytest.approx(below.pose.position, abs=5e-6)
+
+
+@pytest.mark.slow
+def test_soft_mock_mounts_come_to_rest_on_a_stiff_body() -> None:
+    """Where the force alone, without the stiffness of the contact, would move both sensors to and fro."""
+    mounts = [
+        f"arms.{arm}.mock.mount.{word}"
+        for arm in ("lower", "upper")
+        for word in ("stiffness=0.5 N/mm", "damping_time=0.1 s")
+    ]
+    stiff = ["scene.body.material.youngs_modulus=1 MPa", "start.approach_step=0.2 mm"]
+    with opened("mock", *SMALL, *TINY, *mounts, *stiff, *rig_addresses()) as found:
+        pose = found.rig.reset().arms["upper"].pose
+        found.rig.step(Action({"upper": Pose(pose.position - [0.0, 0.0, 0.5e-3], pose.quaternion)}))
+        forces = [-found.rig.step(Action({}))[0].arms["upper"].wrench[2] for _ in range(10)]
+    assert forces[-3:] == pytest.approx([forces[-1]] * 3, rel=0.02)
+    # The arms have closed in by 0.5 mm since a light touch: three springs in series, two of them the mounts.
+    assert 0.03 < forces[-1] < 0.5e-3 * 250.0 + 0.1

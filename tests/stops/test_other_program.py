@@ -55,7 +55,10 @@ def test_while_another_program_drives_the_arm_it_is_reported(
     figure(f"{name}: reported after it was sent", 1e3 * reported, "ms", at_most=None)
     assert reported < 1.0  # however busy the machine is: not when that program ends
     assert not measuring or late <= 20e-3
-    assert said[0]["status"] in ("PROGRAM_STOPPED", "OTHER_PROGRAM")  # what comes later may be of a busy machine
+    # A worker that a busy machine has stalled may see first that the arm is not where it was sent.
+    by_name = [each for each in said if measuring or each["status"] != "NOT_FOLLOWING"]
+    assert by_name and by_name[0]["status"] in ("PROGRAM_STOPPED", "OTHER_PROGRAM"), said
+    assert by_name[0]["time"] - event < 1.0  # what comes later may be of a busy machine, too
     assert not trial.mock.faults.state().program
     moved = np.linalg.norm(seen["position"][-1] - seen["position"][first])
     assert moved > 0.1, log  # the other program was not disturbed

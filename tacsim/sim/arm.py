@@ -184,8 +184,7 @@ class SimArm:
         """Moves the frame to where it is once the arm holds it at `arm`."""
         if self._mount is not None:
             here = self._world.pose(self.frame).position
-            others = [self._world.pose(frame).position for frame in self._opposite]
-            opposite = np.mean(others, axis=0) if others else None
+            opposite = [self._world.pose(frame).position for frame in self._opposite]
             arm = Pose(self._mount.move_arm(arm.position, here, self._world_force(), opposite), arm.quaternion)
         self._clock.command(self.frame, arm, limited=limited)
 

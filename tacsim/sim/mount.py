@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -43,14 +43,14 @@ class ElasticMount:
         return self._arm
 
     def move_arm(
-        self, target: FloatArray, sensor: FloatArray, force: FloatArray, opposite: FloatArray | None = None
+        self, target: FloatArray, sensor: FloatArray, force: FloatArray, opposite: Sequence[FloatArray] = ()
     ) -> FloatArray:
         """The arm goes to `target` (3,). Returns where the sensor (now at `sensor`, under `force`) then is [m].
 
-        opposite: (3,) the present place of what presses against the sensor [m]; None: it stands still.
+        opposite: present positions (3,) of the sensors that press against this one [m]; none: a body that stands still.
         """
         displacement = sensor - self.arm_position(sensor, force)
-        self._measure_contact(sensor if opposite is None else sensor - opposite, force)
+        self._measure_contact(sensor - np.mean(opposite, axis=0) if opposite else sensor, force)
         rate = 1.0 + self._contact * self._compliance
         share = -math.expm1(-rate * self._share_of_damping_time) / rate
         self._arm = np.array(target)

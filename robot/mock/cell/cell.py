@@ -194,8 +194,7 @@ class MockCell(Closing):
             sensor = self._sensor_on[arm]
             held, here = poses[sensor], self._placed[sensor]
             force = se3.rotate(here, self._scene_frame.wrenches[sensor][:3])
-            others = [pose.position for name, pose in self._placed.items() if name != sensor]
-            opposite = np.mean(others, axis=0) if others else None
+            opposite = [pose.position for name, pose in self._placed.items() if name != sensor]
             moved = mount.move_arm(held.position, here.position, force, opposite)
             poses[sensor] = Pose(moved, held.quaternion)
         return poses

@@ -72,7 +72,7 @@ def test_two_mounts_and_a_body_relax_as_three_springs_and_two_dampers(
         for name, sign, other in (("lower", -1.0, "upper"), ("upper", 1.0, "lower")):
             mount, target, push = mounts[name], np.array([0.0, 0.0, arms[name]]), np.array([0.0, 0.0, sign * force])
             assert mount is not None
-            sensors[name] = mount.move_arm(target, before[name], push, before[other])
+            sensors[name] = mount.move_arm(target, before[name], push, [before[other]])
 
 
 def test_rigid_mount_is_none_and_a_soft_one_is_refused() -> None:

@@ -44,7 +44,10 @@ POLICIES: dict[str, dict[str, tuple[str, list[str]]]] = {
             [*MAPS, "features.touch=[moved, wrench, stepped]", "features.remembered=[moved, wrench]"],
         ),
     },
-    "lengthen": {"maps": ("lengthen", ["dagger.epochs=20"])},
+    "lengthen": {
+        "numbers": ("lengthen", ["features.maps=[]"]),
+        "maps": ("lengthen", ["dagger.epochs=20"]),
+    },
     "hold": {
         "flow": ("hold", EQUAL_BUDGET),
         "depth": ("hold", [*EQUAL_BUDGET, "features.flow=false", "features.touch=[area, depth, wrench, grip]"]),

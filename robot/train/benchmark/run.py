@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from robot.common.file_lock import hold_lock
 from robot.train.benchmark.episodes import Split, load_split, subset_size
 from robot.train.benchmark.fingerprint import machine, physics
 from robot.train.benchmark.play import SplitPlayer, Warn
@@ -21,7 +23,7 @@ ReportScore = Callable[[Path, Score], None]
 
 
 class OtherRun(ValueError):
-    """A score that was begun with other settings cannot be continued."""
+    """A score that was begun with other settings, or that another process writes, cannot be continued."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,18 +79,37 @@ def run_benchmark(
         split = load_split(run.task, name)
         if run.rig == "mock":
             require_mock(split)
-        wanted = [open_score(run.folder, new_score(split, policy, run.subset, run.rig)) for policy in run.policies]
-        numbers = sorted({number for _, score in wanted for number in _missing(score, run.first)})
-        if numbers:
-            with _make_player(split, numbers, run) as player:
-                for _, score in wanted:
-                    player.require_policy(score.policy, warn)
-                for chosen in [[number] for number in numbers] if run.rig == "mock" else [numbers]:
-                    wanted = [_play(player, path, score, chosen, report_progress) for path, score in wanted]
-        for path, score in wanted:
+        new = [new_score(split, policy, run.subset, run.rig) for policy in run.policies]
+        with ExitStack() as locks:
+            for path in {score_path(run.folder, score) for score in new}:
+                _lock_score(path, locks)
+            played = _play_split(run, split, [open_score(run.folder, score) for score in new], report_progress, warn)
+        for path, score in played:
             report_score(path, score)
-        found += wanted
+        found += played
     return found
+
+
+def _lock_score(path: Path, locks: ExitStack) -> None:
+    try:
+        locks.enter_context(hold_lock(path))
+    except BlockingIOError:
+        raise OtherRun(f"{path}: another process writes this score; wait for it, or end it") from None
+
+
+def _play_split(
+    run: Run, split: Split, scores: list[tuple[Path, Score]], report_progress: ReportProgress, warn: Warn
+) -> list[tuple[Path, Score]]:
+    """Plays all episodes that the scores do not have. Returns the complete scores."""
+    numbers = sorted({number for _, score in scores for number in _missing(score, run.first)})
+    if not numbers:
+        return scores
+    with _make_player(split, numbers, run) as player:
+        for _, score in scores:
+            player.require_policy(score.policy, warn)
+        for chosen in [[number] for number in numbers] if run.rig == "mock" else [numbers]:
+            scores = [_play(player, path, score, chosen, report_progress) for path, score in scores]
+    return scores
 
 
 def _make_player(split: Split, numbers: Sequence[int], run: Run) -> SplitPlayer | WirePlayer:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import robot.train.benchmark.play as play
+from robot.common.file_lock import hold_lock
 from robot.train.benchmark.blind import BlindMotion, BlindWeights, start_numbers
 from robot.train.benchmark.hashing import hash_document
 from robot.train.benchmark.run import OtherRun, Run, run_benchmark
@@ -178,6 +179,13 @@ def test_run_with_another_subject_overwrites_nothing(task: str, played: tuple[Pa
     with pytest.raises(OtherRun, match="another task_sha256"):
         run(task, tmp_path, "analytic")
     assert path.read_bytes() == before
+
+
+def test_score_that_another_process_writes_is_left_alone(task: str, played: tuple[Path, Score], tmp_path: Path) -> None:
+    path = tmp_path / played[0].relative_to(played[0].parents[2])
+    with hold_lock(path), pytest.raises(OtherRun, match="another process writes this score"):
+        run(task, tmp_path, "analytic")
+    assert not path.exists()
 
 
 def test_missing_policy_is_refused_before_anything_is_simulated(task: str, tmp_path: Path) -> None:

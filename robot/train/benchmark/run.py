@@ -80,9 +80,9 @@ def run_benchmark(
         if run.rig == "mock":
             require_mock(split)
         new = [new_score(split, policy, run.subset, run.rig) for policy in run.policies]
-        with ExitStack() as locks:
+        with ExitStack() as held:
             for path in {score_path(run.folder, score) for score in new}:
-                _lock_score(path, locks)
+                _lock_score(path, held)
             played = _play_split(run, split, [open_score(run.folder, score) for score in new], report_progress, warn)
         for path, score in played:
             report_score(path, score)
@@ -90,9 +90,9 @@ def run_benchmark(
     return found
 
 
-def _lock_score(path: Path, locks: ExitStack) -> None:
+def _lock_score(path: Path, held: ExitStack) -> None:
     try:
-        locks.enter_context(hold_lock(path))
+        held.enter_context(hold_lock(path))
     except BlockingIOError:
         raise OtherRun(f"{path}: another process writes this score; wait for it, or end it") from None
 

@@ -13,7 +13,7 @@ from tacsim.models.sensor import CanonicalGrid
 from tacsim.models.task import LengthenConfig
 from tacsim.tasks.squeeze import BOTH, estimated_height
 from tacsim.tasks.task import Axis, Estimator, GoalOutOfReach, Task
-from tacsim.tasks.tuning import LENGTH_RULE, MIN_LENGTH_SHARE
+from tacsim.tasks.tuning import LENGTH_RULE, MIN_LENGTH_SHARE, MIN_PRESSED_DEPTH
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Lengthen(Task):
         def tactile_estimate(observation: Observation) -> float | None:
             found = length(observation)
             touched = all(observation.tactile[name].contact.any() for name in BOTH)
-            return abs(found - self.config.goal) if touched else None
+            return abs(found - self.config.goal) if touched and found is not None else None
 
         return tactile_estimate
 
@@ -87,27 +87,29 @@ class Lengthen(Task):
 
 class LengthEstimate:
     """Length of the body along x by touch [m] = a + b * L0 * sqrt(H0 / height) + c * extent of the contact, with extent
-    L0 and height H0 at the first observation: the volume is kept, and the contact shows two faces. The factors are
-    those of least squares on training draws of the benchmark."""
+    L0 and height H0 when both gels are first pressed deeply enough: the volume is kept, and the contact shows two
+    faces. None before. The factors are those of least squares on training draws of the benchmark."""
 
     def __init__(self, canonical: CanonicalGrid) -> None:
         self._canonical = canonical
-        self._first: tuple[float, float] | None = None  # extent and height at the first observation [m]
+        self._first: tuple[float, float] | None = None  # extent and height at the first press [m]
 
-    def __call__(self, observation: Observation) -> float:
+    def __call__(self, observation: Observation) -> float | None:
         """Raises ValueError for a sensor without height."""
         min_height = 1e-3  # [m]; arms that measure less are wrong
         constant, of_volume, of_contact = LENGTH_RULE
         extent, height = pressed_extent(observation, self._canonical), estimated_height(observation)
         if self._first is None:
+            if extent == 0.0:
+                return None
             self._first = extent, height
         by_volume = self._first[0] * float(np.sqrt(max(self._first[1], 0.0) / max(height, min_height)))
         return constant + of_volume * by_volume + of_contact * extent
 
 
 class LengthRule:
-    """Each sensor closes by half of what is left of the length that touch estimates. With `through` it goes on closing
-    at the full rate."""
+    """Each sensor closes by half of what is left of the length that touch estimates, at the full rate before there is an
+    estimate. With `through` it goes on closing at the full rate."""
 
     def __init__(self, config: LengthenConfig, through: bool) -> None:
         self._goal, self._max_step, self._through = config.goal, config.max_step, through
@@ -121,9 +123,10 @@ class LengthRule:
         self._length = LengthEstimate(CanonicalGrid())
 
     def __call__(self, observation: Observation) -> Action:
-        left = self._goal - self._length(observation)
-        step = self._max_step if self._through and left <= 0.0 else float(np.clip(left / 2, 0.0, self._max_step))
-        return closing_action(observation, step)
+        length = self._length(observation)
+        if length is None or (self._through and length >= self._goal):
+            return closing_action(observation, self._max_step)
+        return closing_action(observation, float(np.clip((self._goal - length) / 2, 0.0, self._max_step)))
 
 
 def closing_action(observation: Observation, step: float) -> Action:
@@ -137,17 +140,18 @@ def closing_action(observation: Observation, step: float) -> Action:
 
 def pressed_extent(observation: Observation, canonical: CanonicalGrid) -> float:
     """Extent along the x of the sensors [m], the mean of both gels, of the part that is pressed at least half as deep
-    as the deepest point: the length of a rectangle with the same second moment, which a few noisy points change little;
-    0 for a gel that is not pressed. Raises ValueError for a sensor without height."""
+    as the deepest point: the length of a rectangle with the same second moment, which a few noisy points change little.
+    0 if a gel is pressed by less than MIN_PRESSED_DEPTH. Raises ValueError for a sensor without height."""
     extents = []
     for name in sorted(BOTH):
         touch = observation.tactile[name]
         if touch.height is None:
             raise ValueError("the length of a body is found from the gel's height, and this sensor delivers none")
         deepest = float(touch.height.max(where=touch.valid, initial=0.0))
-        pressed = touch.valid & (touch.height > 0.5 * deepest) & (deepest > 0.0)
-        columns = np.nonzero(pressed)[1]
-        extents.append(float(np.sqrt(12.0 * columns.var() + 1.0)) * canonical.pitch if len(columns) else 0.0)
+        if deepest < MIN_PRESSED_DEPTH:
+            return 0.0
+        columns = np.nonzero(touch.valid & (touch.height > 0.5 * deepest))[1]
+        extents.append(float(np.sqrt(12.0 * columns.var() + 1.0)) * canonical.pitch)
     return float(np.mean(extents))
 
 

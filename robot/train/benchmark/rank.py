@@ -189,7 +189,8 @@ def draw_ranking(rankings: Sequence[Ranking], path: Path, names: tuple[str, str]
         panel.plot([0, 100], [0, 100], color="#bbbbbb", linewidth=1, zorder=0)
         rho = ranking.by_success.spearman
         panel.set_title(f"{ranking.task}: {'no order' if rho is None else f'ρ = {rho.value:.2f}'}", fontsize=10)
-        for pair in ranking.pairs:
+        places = [tuple(side.value for side in pair.success) for pair in ranking.pairs]
+        for number, pair in enumerate(ranking.pairs):
             one, two = pair.success
             panel.errorbar(
                 100 * one.value,
@@ -198,11 +199,12 @@ def draw_ranking(rankings: Sequence[Ranking], path: Path, names: tuple[str, str]
                 yerr=_error_lengths(two),
                 fmt="o",
                 color=colours[_short_name(pair.policy)],
-                markersize=7,
+                markersize=7 + 4 * places[number + 1 :].count(places[number]),  # policies at the same place are rings
                 elinewidth=0.6,
                 alpha=0.9,
             )
         panel.set(xlim=(-5, 105), ylim=(-5, 105), box_aspect=1)
+        panel.tick_params(labelbottom=True)
     figure.supxlabel(f"success, {names[0]} [%]", fontsize=10)
     figure.supylabel(f"success, {names[1]} [%]", fontsize=10)
     for policy, colour in colours.items():

@@ -108,8 +108,8 @@ class LengthEstimate:
 
 
 class LengthRule:
-    """Each sensor closes by half of what is left of the length that touch estimates, at the full rate before there is an
-    estimate. With `through` it goes on closing at the full rate."""
+    """Each sensor closes by half of what is left of the length that touch estimates; at the full rate before there is
+    an estimate, and with `through` after the goal, too."""
 
     def __init__(self, config: LengthenConfig, through: bool) -> None:
         self._goal, self._max_step, self._through = config.goal, config.max_step, through

@@ -16,7 +16,7 @@ BALL_CIRCLE_SHARE = 0.8  # of a ball's diameter: radius of the circle on which i
 
 # lengthen.py
 LENGTH_RULE = (0.51e-3, 0.440, 0.596)  # [m, -, -] of 48 training draws, up to 14 mm long; deviation 0.81 mm
-MIN_PRESSED_DEPTH = 0.04e-3  # whose extent pictures with noise show; in a touch of 0.02 mm it is millimetres off [m]
+MIN_PRESSED_DEPTH = 0.04e-3  # of a contact whose length pictures show; at 0.02 mm noise moves it by millimetres [m]
 MIN_LENGTH_SHARE = (
     0.2  # assumed growth of the body over the displacement of the sensors, at least; measured: 0.3 to 1.1
 )

@@ -79,15 +79,34 @@ def run_benchmark(
         split = load_split(run.task, name)
         if run.rig == "mock":
             require_mock(split)
-        new = [new_score(split, policy, run.subset, run.rig) for policy in run.policies]
-        with ExitStack() as held:
-            for path in {score_path(run.folder, score) for score in new}:
-                _lock_score(path, held)
-            played = _play_split(run, split, [open_score(run.folder, score) for score in new], report_progress, warn)
-        for path, score in played:
+        scores = [open_score(run.folder, new_score(split, policy, run.subset, run.rig)) for policy in run.policies]
+        numbers = sorted({number for _, score in scores for number in _missing(score, run.first)})
+        if numbers:
+            scores = _play_split(run, split, scores, numbers, report_progress, warn)
+        for path, score in scores:
             report_score(path, score)
-        found += played
+        found += scores
     return found
+
+
+def _play_split(
+    run: Run,
+    split: Split,
+    scores: list[tuple[Path, Score]],
+    numbers: Sequence[int],
+    report_progress: ReportProgress,
+    warn: Warn,
+) -> list[tuple[Path, Score]]:
+    """Plays those of the episodes that the scores do not have. Returns the scores with them."""
+    with _make_player(split, numbers, run) as player, ExitStack() as held:
+        for _, score in scores:
+            player.require_policy(score.policy, warn)
+        for path in {path for path, _ in scores}:
+            _lock_score(path, held)
+        scores = [open_score(run.folder, score) for _, score in scores]  # as another process may have left them
+        for chosen in [[number] for number in numbers] if run.rig == "mock" else [numbers]:
+            scores = [_play(player, path, score, chosen, report_progress) for path, score in scores]
+    return scores
 
 
 def _lock_score(path: Path, held: ExitStack) -> None:
@@ -95,21 +114,6 @@ def _lock_score(path: Path, held: ExitStack) -> None:
         held.enter_context(hold_lock(path))
     except BlockingIOError:
         raise OtherRun(f"{path}: another process writes this score; wait for it, or end it") from None
-
-
-def _play_split(
-    run: Run, split: Split, scores: list[tuple[Path, Score]], report_progress: ReportProgress, warn: Warn
-) -> list[tuple[Path, Score]]:
-    """Plays all episodes that the scores do not have. Returns the complete scores."""
-    numbers = sorted({number for _, score in scores for number in _missing(score, run.first)})
-    if not numbers:
-        return scores
-    with _make_player(split, numbers, run) as player:
-        for _, score in scores:
-            player.require_policy(score.policy, warn)
-        for chosen in [[number] for number in numbers] if run.rig == "mock" else [numbers]:
-            scores = [_play(player, path, score, chosen, report_progress) for path, score in scores]
-    return scores
 
 
 def _make_player(split: Split, numbers: Sequence[int], run: Run) -> SplitPlayer | WirePlayer:

@@ -38,6 +38,7 @@ from robot.arm.trajectory import (
     find_stopping_point,
     is_at_target,
     is_standing_still,
+    least_gap,
     limit_speed,
     motion_at_rest,
     rotation_from_quaternion,
@@ -58,7 +59,6 @@ from tacsim.limits import (
     stopping_position,
 )
 
-MAX_LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
 PACKAGE_DELAY = 3 * PERIOD  # from a change of the arm's speed until its package reaches the servo [s]
 
 
@@ -362,15 +362,13 @@ class Servo:
     def _braking_gaps(
         self, motion: MotionState, partners: Sequence[Record | None], end: FloatArray | None = None
     ) -> list[float]:
-        """Distance [m] between the braking path of `motion` and that of each other arm, minus the keep-out distance and
-        minus the distance that the other arm may cover within MAX_LOOP_OFFSET (the end of a braking path moves at most
-        twice as fast as the arm)."""
+        """Distance [m] between the braking path of `motion` and that of each other arm, minus `least_gap`."""
         end = find_stopping_point(motion, self.config.acceleration) if end is None else end
         gaps = []
         for partner, record in zip(self.config.partners, partners, strict=True):
             assert record is not None  # without it the arm waits
             gap = segment_distance(motion.position, end, record["position"], record["stopping_point"])
-            gaps.append(gap - partner.distance - 2.0 * float(record["top_speed"]) * MAX_LOOP_OFFSET)
+            gaps.append(gap - least_gap(partner.distance, float(record["top_speed"])))
         return gaps
 
     def _clip_target(self, start: MotionState) -> None:

@@ -31,6 +31,14 @@ from robot.common.tcp import ArmFrames, Measured
 from tacsim.interface import FloatArray
 
 PERIOD = 2e-3  # of the servo loop [s]
+MAX_LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
+
+
+def least_gap(keep_out: float, partner_speed: float) -> float:
+    """Gap [m] to the braking path of another arm that the servo keeps: the keep-out distance [m], and what that arm, at
+    most at `partner_speed` [m/s], may cover within MAX_LOOP_OFFSET (the end of its braking path moves at most twice as
+    fast as the arm)."""
+    return keep_out + 2.0 * partner_speed * MAX_LOOP_OFFSET
 
 
 class MotionLimits(Protocol):

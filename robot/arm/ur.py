@@ -31,7 +31,7 @@ from robot.arm.channel import (
 from robot.arm.connections import Dashboard
 from robot.arm.status import CONNECTING_ADVICE, ArmStatus, PackageLog, StatusHistory, describe_lost_link
 from robot.arm.time_alignment import await_state_at
-from robot.arm.trajectory import PERIOD
+from robot.arm.trajectory import PERIOD, least_gap
 from robot.common import Closing
 from robot.common.kinematics import Kinematics
 from robot.common.process import Child
@@ -353,12 +353,13 @@ class URArm(Closing):
             raise self._error_of(status)
 
     def _keep_out_spheres(self) -> list[tuple[np.ndarray, float]]:
-        """Positions (3,) of the other arms [m], and the keep-out distance to each [m]."""
+        """Positions (3,) of the other arms [m], and the gap to each [m] that the servo keeps: it would not reach a
+        nearer target."""
         spheres = []
         for partner, channel in zip(self._worker_config.partners, self._partner_channels, strict=True):
             record = channel.states.latest()
             if record is not None:
-                spheres.append((record["position"], partner.distance))
+                spheres.append((record["position"], least_gap(partner.distance, float(record["top_speed"]))))
         return spheres
 
     def _error_of(self, status: ArmStatus) -> DeviceError:

@@ -68,6 +68,20 @@ def test_pair_keep_out_holds_for_either_moving_arm(pair: Pair, figure: Record) -
     go(left, a)
 
 
+@pytest.mark.slow
+def test_pair_reaches_the_targets_that_the_keep_out_shortens(pair: Pair) -> None:
+    """Head on, both come to rest at what `command` returns: a rig in lock step waits for that."""
+    left, right, _ = pair
+    ahead, against = moved(left.state().pose, x=0.05), moved(right.state().pose, x=-0.05)
+
+    def have_arrived() -> bool:
+        sent = left.command(ahead), right.command(against)
+        return all(to is not None and arm.arrived(to, within=2e-6) for arm, to in zip((left, right), sent, strict=True))
+
+    until(have_arrived)
+    assert KEEP_OUT < apart(left, right) < KEEP_OUT + 1e-3
+
+
 @pytest.mark.promise(15)
 def test_pair_arm_waits_for_missing_partner(mock: MockUR) -> None:
     with URArm(config(), "left", keep_out={"right": 0.04}) as arm:

@@ -35,10 +35,10 @@ from robot.arm.trajectory import (
     MotionLimits,
     MotionState,
     SpeedScaling,
+    find_min_gap,
     find_stopping_point,
     is_at_target,
     is_standing_still,
-    least_gap,
     limit_speed,
     motion_at_rest,
     rotation_from_quaternion,
@@ -362,13 +362,13 @@ class Servo:
     def _braking_gaps(
         self, motion: MotionState, partners: Sequence[Record | None], end: FloatArray | None = None
     ) -> list[float]:
-        """Distance [m] between the braking path of `motion` and that of each other arm, minus `least_gap`."""
+        """Distance [m] between the braking path of `motion` and that of each other arm, minus `find_min_gap`."""
         end = find_stopping_point(motion, self.config.acceleration) if end is None else end
         gaps = []
         for partner, record in zip(self.config.partners, partners, strict=True):
             assert record is not None  # without it the arm waits
             gap = segment_distance(motion.position, end, record["position"], record["stopping_point"])
-            gaps.append(gap - least_gap(partner.distance, float(record["top_speed"])))
+            gaps.append(gap - find_min_gap(partner.distance, float(record["top_speed"])))
         return gaps
 
     def _clip_target(self, start: MotionState) -> None:

@@ -34,7 +34,7 @@ PERIOD = 2e-3  # of the servo loop [s]
 MAX_LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
 
 
-def least_gap(keep_out: float, partner_speed: float) -> float:
+def find_min_gap(keep_out: float, partner_speed: float) -> float:
     """Gap [m] to the braking path of another arm that the servo keeps: the keep-out distance [m], and what that arm, at
     most at `partner_speed` [m/s], may cover within MAX_LOOP_OFFSET (the end of its braking path moves at most twice as
     fast as the arm)."""

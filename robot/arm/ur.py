@@ -31,7 +31,7 @@ from robot.arm.channel import (
 from robot.arm.connections import Dashboard
 from robot.arm.status import CONNECTING_ADVICE, ArmStatus, PackageLog, StatusHistory, describe_lost_link
 from robot.arm.time_alignment import await_state_at
-from robot.arm.trajectory import PERIOD, least_gap
+from robot.arm.trajectory import PERIOD, find_min_gap
 from robot.common import Closing
 from robot.common.kinematics import Kinematics
 from robot.common.process import Child
@@ -359,7 +359,7 @@ class URArm(Closing):
         for partner, channel in zip(self._worker_config.partners, self._partner_channels, strict=True):
             record = channel.states.latest()
             if record is not None:
-                spheres.append((record["position"], least_gap(partner.distance, float(record["top_speed"]))))
+                spheres.append((record["position"], find_min_gap(partner.distance, float(record["top_speed"]))))
         return spheres
 
     def _error_of(self, status: ArmStatus) -> DeviceError:

@@ -362,7 +362,8 @@ class Servo:
     def _braking_gaps(
         self, motion: MotionState, partners: Sequence[Record | None], end: FloatArray | None = None
     ) -> list[float]:
-        """Distance [m] between the braking path of `motion` and that of each other arm, minus `find_min_gap`."""
+        """Distance [m] between the braking path of `motion` and that of each other arm, minus the gap to keep
+        (`find_min_gap`)."""
         end = find_stopping_point(motion, self.config.acceleration) if end is None else end
         gaps = []
         for partner, record in zip(self.config.partners, partners, strict=True):

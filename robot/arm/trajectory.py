@@ -35,9 +35,9 @@ MAX_LOOP_OFFSET = 2 * PERIOD  # between the loops of two arms [s]
 
 
 def find_min_gap(keep_out: float, partner_speed: float) -> float:
-    """Gap [m] to the braking path of another arm that the servo keeps: the keep-out distance [m], and what that arm, at
-    most at `partner_speed` [m/s], may cover within MAX_LOOP_OFFSET (the end of its braking path moves at most twice as
-    fast as the arm)."""
+    """Smallest gap [m] that the servo keeps to the braking path of another arm: the keep-out distance [m], plus what
+    that path covers within MAX_LOOP_OFFSET (its end moves at most twice as fast as the arm, whose limit is
+    `partner_speed` [m/s])."""
     return keep_out + 2.0 * partner_speed * MAX_LOOP_OFFSET
 
 

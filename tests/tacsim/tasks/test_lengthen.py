@@ -75,18 +75,20 @@ def test_estimate_follows_volume_and_contact() -> None:
     assert estimate(later) == pytest.approx(constant + of_volume * by_volume + of_contact * 5.5e-3)
 
 
-def face(depth: float, noise: float) -> Any:
+def face(depth: float, noise: float, seed: int = 0) -> Any:
     """A face of 9 mm, in heights with noise."""
     height = np.zeros((64, 64), np.float32)
     height[14:50, 14:50] = depth
-    height += np.random.default_rng(0).normal(0.0, noise, height.shape).astype(np.float32)
+    height += np.random.default_rng(seed).normal(0.0, noise, height.shape).astype(np.float32)
     touch = SimpleNamespace(height=height, valid=np.ones_like(height, bool))
     arms = {"lower": SimpleNamespace(pose=Pose()), "upper": SimpleNamespace(pose=Pose(np.array([0.0, 0.0, 9e-3])))}
     return SimpleNamespace(tactile={"lower": touch, "upper": touch}, arms=arms)
 
 
-def test_extent_of_a_press_withstands_noise() -> None:
-    assert pressed_extent(face(50e-6, 10e-6), CanonicalGrid()) == pytest.approx(9e-3, abs=0.5e-3)
+@pytest.mark.parametrize("seed", range(5))
+def test_extent_of_a_press_withstands_noise(seed: int) -> None:
+    """With seeds 1 and 4 the outermost pressed points are 12.5 and 13 mm apart."""
+    assert pressed_extent(face(50e-6, 18e-6, seed), CanonicalGrid()) == pytest.approx(9e-3, abs=0.5e-3)
 
 
 def test_light_touch_is_no_measurement_and_the_rule_closes_on() -> None:

@@ -82,12 +82,13 @@ def require_policy_name(name: str, other_names: Sequence[str] = ()) -> None:
         return
     if name in (*NAMES, *other_names) or ":" in name:
         return
-    allowed = "'scripted', 'grip', 'learned', 'path/to/file.onnx', 'path/to/file.csv', or 'package.module:attribute'"
+    files = ("path/to/file.onnx", "path/to/file.csv")
+    allowed = ", ".join(f"'{each}'" for each in (*dict.fromkeys((*other_names, *NAMES)), *files))
     if name.endswith(".py"):
         hint = f"; name what the file defines: '{path.stem}:NAME'"
     else:
         hint = suggest_word(name, (*NAMES, *other_names))
-    raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}{hint}")
+    raise PolicyNotFound(f"no policy '{name}'; allowed: {allowed}, or 'package.module:attribute'{hint}")
 
 
 def _find_shipped_policy(task: Task | None) -> Path:

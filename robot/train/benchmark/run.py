@@ -71,12 +71,13 @@ def run_benchmark(
 
     An episode in which the policy raises is a failed episode, with the reason in its score; the run continues.
     report_score: called with each score when it is complete.
-    Raises PolicyNotFound, IncompatibleRig, SplitChanged, OtherRun, ScoreEdited, and the errors of `SplitPlayer` and
-    `WirePlayer`.
+    Raises ValueError for more episodes than the subset has; PolicyNotFound, IncompatibleRig, SplitChanged, OtherRun,
+    ScoreEdited, and the errors of `SplitPlayer` and `WirePlayer`.
     """
     found: list[tuple[Path, Score]] = []
     for name in run.splits:
         split = load_split(run.task, name)
+        _require_episodes(run, split)
         if run.rig == "mock":
             require_mock(split)
         scores = [open_score(run.folder, new_score(split, policy, run.subset, run.rig)) for policy in run.policies]
@@ -87,6 +88,14 @@ def run_benchmark(
             report_score(path, score)
         found += scores
     return found
+
+
+def _require_episodes(run: Run, split: Split) -> None:
+    """Raises ValueError if more episodes are asked for than the subset has."""
+    number, whole = subset_size(run.subset, len(split.episodes)), len(split.episodes)
+    if run.first is not None and run.first > number:
+        more = f"; with --full {whole}" if number < whole else ""
+        raise ValueError(f"--episodes {run.first}: the subset '{run.subset}' has {number} episodes{more}")
 
 
 def _play_split(

@@ -15,6 +15,7 @@ import robot.train.benchmark.play as play
 from robot.common.file_lock import hold_lock
 from robot.train.benchmark.blind import BlindMotion, BlindWeights, start_numbers
 from robot.train.benchmark.hashing import hash_document
+from robot.train.benchmark.policies import BASELINES
 from robot.train.benchmark.run import OtherRun, Run, run_benchmark
 from robot.train.benchmark.score import NotAScore, Score, ScoreEdited, read_score, write_score
 from robot.train.benchmark.verify import WrongSubject, verify_score
@@ -194,6 +195,19 @@ def test_missing_policy_is_refused_before_anything_is_simulated(task: str, tmp_p
     assert not (tmp_path / "out").exists()
     result = tacsim("benchmark", "run", task, "--policy", "blind", "--out", tmp_path / "out")
     assert result.exit_code == 2 and "fit-blind" in result.stderr
+
+
+def test_unknown_policy_is_answered_by_the_names_of_the_benchmark(task: str, tmp_path: Path) -> None:
+    result = tacsim("benchmark", "run", task, "--policy", "analitic", "--out", tmp_path)
+    assert result.exit_code == 2 and "did you mean 'analytic'" in result.stderr
+    assert all(f"'{name}'" in result.stderr for name in (*BASELINES, "learned"))
+
+
+def test_more_episodes_than_the_subset_has_are_refused(task: str, tmp_path: Path) -> None:
+    for given, words in ((("squeeze",), "has 24 episodes; with --full 200"), ((task, "--full"), "has 5 episodes\n")):
+        result = tacsim("benchmark", "run", *given, "--policy", "random", "--episodes", 201, "--out", tmp_path)
+        assert result.exit_code == 2 and words in result.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_blind_motion_is_fitted_and_does_not_depend_on_touch(task: str, tmp_path: Path) -> None:

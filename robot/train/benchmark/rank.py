@@ -47,7 +47,7 @@ class Ranking:
     unit: Unit  # in which distances are shown
     pairs: tuple[Pair, ...]
     by_success: Correlation
-    by_distance: Correlation  # of the mean distance at the end; it has no ties
+    by_distance: Correlation  # of the mean distance at the end of the episodes that began; it has no ties
 
 
 def rank_policies(first: Sequence[Score], second: Sequence[Score]) -> list[Ranking]:
@@ -86,9 +86,12 @@ def _rank_task(task: str, scores: Sequence[tuple[Score, Score]]) -> Ranking:
     common = sorted(set.intersection(*(set(side) for pair in sides for side in pair)))
     if len(common) < 2:
         raise NotComparable(f"the policies on '{task}' have {len(common)} common episodes; complete the runs")
-    # (sides, policies, episodes); an episode that did not begin is left out of the means of the distance
+    # (sides, policies, episodes)
     success = np.array([[[pair[side][n].success for n in common] for pair in sides] for side in (0, 1)], float)
     distance = np.array([[[_number(pair[side][n].distance) for n in common] for pair in sides] for side in (0, 1)])
+    begun = ~np.isnan(distance).any(axis=(0, 1))
+    if not begun.any():
+        raise NotComparable(f"no common episode on '{task}' began; the scores say why")
     pairs = [
         Pair(one.policy, len(common), (_rate(success[0, index]), _rate(success[1, index])))
         for index, (one, _) in enumerate(scores)
@@ -98,7 +101,7 @@ def _rank_task(task: str, scores: Sequence[tuple[Score, Score]]) -> Ranking:
         unit=scores[0][0].unit,
         pairs=tuple(sorted(pairs, key=lambda pair: -pair.success[0].value)),
         by_success=_correlate(success),
-        by_distance=_correlate(-distance),
+        by_distance=_correlate(-distance[:, :, begun]),
     )
 
 
@@ -114,8 +117,8 @@ def _correlate(values: FloatArray) -> Correlation:
     """values: (2, policies, episodes), larger is better."""
     episodes = values.shape[2]
     chosen = np.random.default_rng(0).integers(episodes, size=(DRAWS, episodes))
-    drawn = np.nanmean(values[:, :, chosen], axis=3).transpose(2, 0, 1)  # (draws, 2, policies)
-    means = np.nanmean(values, axis=2)
+    drawn = np.mean(values[:, :, chosen], axis=3).transpose(2, 0, 1)  # (draws, 2, policies)
+    means = np.mean(values, axis=2)
     return Correlation(
         spearman=_interval(spearman, means, drawn),
         kendall=_interval(kendall, means, drawn),

@@ -19,9 +19,9 @@ from tacsim.models.task import Unit, unit_of
 from tacsim.models.text import printable_line
 
 MAX_BYTES = 32 * 2**20  # of a file; 200 episodes have 100 kB
+RigName = Literal["sim", "mock"]
 # How an episode ended: after its steps, at a limit of force, by divergence of the simulation, by an error of the
 # policy, or before its first step because the reset failed.
-RigName = Literal["sim", "mock"]
 End = Literal["steps", "limit", "diverged", "error", "not begun"]
 
 

@@ -70,6 +70,23 @@ def test_only_common_episodes_count() -> None:
     assert found.pairs[-1].success[0].value == 0.5
 
 
+@pytest.mark.filterwarnings("error")
+def test_distances_of_episodes_that_did_not_begin_do_not_count() -> None:
+    """They are failures: by success they count."""
+
+    def some_not_begun(each: Score, number: int) -> Score:
+        missing = [one.model_copy(update={"distance": None, "success": False}) for one in each.episodes[:number]]
+        return each.model_copy(update={"episodes": (*missing, *each.episodes[number:3])})
+
+    first, second = scores("test", a=1, b=2, c=3), scores("shift-all", a=1, b=2, c=3)
+    (found,) = rank_policies(first, [some_not_begun(each, 2) for each in second])
+    assert {pair.episodes for pair in found.pairs} == {3}
+    assert [pair.success[1].value for pair in found.pairs] == pytest.approx([1 / 3, 0.0, 0.0])
+    assert found.by_distance.spearman is not None and found.by_distance.spearman.low == pytest.approx(1.0)
+    with pytest.raises(NotComparable, match="no common episode on 'small' began"):
+        rank_policies(first, [some_not_begun(each, 3) for each in second])
+
+
 def test_violation_is_the_largest_of_each_policy() -> None:
     simulated, real = np.array([0.1, 0.2, 0.3]), np.array([0.9, 0.4, 0.0])  # the order is turned round
     assert max_rank_violation(simulated, real) == pytest.approx((0.9 + 0.5 + 0.9) / 3)

@@ -56,7 +56,8 @@ HardwareRig = Annotated[
 TrainingFile = Annotated[
     str,
     typer.Argument(
-        help="squeeze, reposition, knead, or the path of a training file.", autocompletion=complete_names("training")
+        help="A shipped training file (`tacsim list training`), or the path of one.",
+        autocompletion=complete_names("training"),
     ),
 ]
 RayCluster = Annotated[

@@ -33,7 +33,7 @@ def train(
     task: Annotated[
         str | None,
         typer.Argument(
-            help="squeeze, reposition, knead, or the path of a training file.",
+            help="A shipped training file (`tacsim list training`), or the path of one.",
             autocompletion=complete_names("training"),
         ),
     ] = None,

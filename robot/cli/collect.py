@@ -180,7 +180,7 @@ def episodes(
     task: Annotated[
         str | None,
         typer.Option(
-            help="squeeze, reposition, knead, lengthen, relief, or a path.",
+            help="A shipped task (`tacsim list task`), or the path of a task file.",
             show_default="the rig's own",
             autocompletion=complete_names("task"),
         ),
@@ -193,7 +193,7 @@ def episodes(
     randomise: Annotated[
         str | None,
         typer.Option(
-            help="Randomisation of the episodes: squeeze, reposition, or a path.",
+            help="Of the episodes: a shipped one (`tacsim list randomisation`), or the path of its file.",
             autocompletion=complete_names("randomisation"),
         ),
     ] = None,

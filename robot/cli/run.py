@@ -47,14 +47,14 @@ def run(
     rig: Annotated[
         str,
         typer.Argument(
-            help="A rig (sim, press, mock, ur5e, ur5e-one, stand, replay), or the path of its file.",
+            help="A shipped rig (`tacsim list rig`), or the path of its file.",
             autocompletion=complete_names("rig"),
         ),
     ] = "sim",
     task: Annotated[
         str | None,
         typer.Option(
-            help="squeeze, reposition, knead, lengthen, relief, the path of a task file, or package.module:name.",
+            help="A shipped task (`tacsim list task`), the path of a task file, or package.module:name.",
             show_default="the rig's own",
             autocompletion=complete_names("task"),
         ),

@@ -134,7 +134,8 @@ def transfer(
     task: Annotated[
         str,
         typer.Argument(
-            help="squeeze, reposition, knead, hold, or the path of a task file.", autocompletion=complete_names("task")
+            help="squeeze, reposition, knead, hold, turn, drawer, or the path of a task file.",
+            autocompletion=complete_names("task"),
         ),
     ],
     policy: Annotated[

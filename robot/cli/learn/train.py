@@ -115,7 +115,7 @@ def _open_run(folder: Path, has_other_options: bool) -> RunFolder:
 def _begin_run(task: str | None, overrides: Sequence[str], out: Path | None, tensorboard: bool) -> RunFolder:
     """A new run in a new folder."""
     if task is None:
-        raise typer.BadParameter("name a task (squeeze, reposition, knead), or a run to continue (--resume)")
+        raise typer.BadParameter("name a training file (`tacsim list training`), or a run to continue (--resume)")
     from tacsim.config import load_model
     from tacsim.models.policy import Training
 

@@ -134,7 +134,7 @@ def transfer(
     task: Annotated[
         str,
         typer.Argument(
-            help="squeeze, reposition, knead, hold, turn, drawer, or the path of a task file.",
+            help="squeeze, hold, turn, peg, drawer; another shipped task or the path of a task file needs --twin.",
             autocompletion=complete_names("task"),
         ),
     ],

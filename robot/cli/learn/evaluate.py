@@ -178,8 +178,11 @@ def transfer(
     from robot.deploy.policy import require_policy_name
     from robot.train.transfer import Study, draw_figure, play_study, summarise
     from tacsim.config import load_model
+    from tacsim.config.kinds import is_name
     from tacsim.models.randomisation import Randomisation
 
+    if twin is None and not is_name(task):
+        raise typer.BadParameter(f"'{task}' has no twin of its own: name the draws of one with --twin")
     twins = load_model(Randomisation, f"{task}-twin" if twin is None else twin)
     policies = tuple(policy or ("learned", "scripted"))
     for name in policies:

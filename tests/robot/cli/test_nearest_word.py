@@ -48,6 +48,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
         ("evaluate squeeze --policy teacher.onnx", "policy 'teacher.onnx': no such file"),
         ("transfer squeeze --policy lerned", "did you mean 'learned'?"),
         ("transfer squeeze --twin squeeze-twn", "did you mean 'squeeze-twin'?"),
+        ("transfer ./mine.yaml", "has no twin of its own"),
         ("identify gel --scene pres x.csv", "did you mean 'press'?"),
         ("calibrate sensor x --kind min --ball-diameter 4mm", "did you mean 'mini'?"),
         ("calibrate sensor --camera mock/uper --kind mini --ball-diameter 4mm", "did you mean 'upper'?"),

@@ -193,7 +193,7 @@ def episodes(
     randomise: Annotated[
         str | None,
         typer.Option(
-            help="Of the episodes: a shipped one (`tacsim list randomisation`), or the path of its file.",
+            help="A shipped randomisation of the episodes (`tacsim list randomisation`), or its path.",
             autocompletion=complete_names("randomisation"),
         ),
     ] = None,

@@ -182,7 +182,7 @@ def transfer(
     from tacsim.models.randomisation import Randomisation
 
     if twin is None and not is_name(task):
-        raise typer.BadParameter(f"'{task}' has no twin of its own: name the draws of one with --twin")
+        raise typer.BadParameter(f"'{task}' has no twin of its own: give --twin, the randomisation that draws one")
     twins = load_model(Randomisation, f"{task}-twin" if twin is None else twin)
     policies = tuple(policy or ("learned", "scripted"))
     for name in policies:

@@ -259,7 +259,7 @@ def test_train_command_trains_exports_and_continues(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "name a task"),
+        ((), "name a training file"),
         (("juggle",), "no training 'juggle'; allowed: "),
         (("squeeze", "--algorithm", "magic"), "algorithm"),
         (("squeeze", "--set", "dagger.round=3"), "did you mean"),

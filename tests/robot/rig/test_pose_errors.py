@@ -20,9 +20,9 @@ def find_contacts(rig: str, *overrides: str) -> list[float]:
     assert observation.arms["lower"].pose.position[:2] == pytest.approx([0.0, 0.0], abs=1e-6)
     width = 16e-3  # of the canonical grid, here and there
     heights = [observation.tactile[name].height for name in ("lower", "upper")]
-    pressed = [np.argwhere(height > 0.5 * height.max()) for height in heights if height is not None]
-    centres = [(cells.mean(axis=0) + 0.5) / heights[0].shape[0] for cells in pressed]  # grids differ: centres of cells
-    return [float(value) for centre in centres for value in width * (centre - 0.5)]
+    # Grids differ, so a pressed cell counts by its centre, not by its index.
+    pressed = [(np.argwhere(each > 0.5 * each.max()) + 0.5) / len(each) for each in heights if each is not None]
+    return [float(value) for each in pressed for value in width * (each.mean(axis=0) - 0.5)]
 
 
 @pytest.mark.slow
